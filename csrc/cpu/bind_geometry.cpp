@@ -31,21 +31,6 @@ void bind_geometry(nb::module_& m) {
             return flip_edges(vertices.data(), mesh, edges.size(0), least_cosine, rounds);
         },
         "vertices", "edges", "edge_faces", "face_edges", "faces", "valences", "least_cosine", "rounds");
-    // points (N, 3), vertices (V, 3), faces (F, 3) with F > 0; squared_distances and closest (N,).
-    def_function(
-        m, "closest_faces",
-        [](Array<const double, 2> points, Array<const double, 2> vertices, Array<const int64_t, 2> faces,
-           Array<double, 1> squared_distances, Array<int64_t, 1> closest) {
-            const Bvh bvh(vertices.data(), faces.data(), faces.size(0));
-            parallel_for(points.size(0), 256, [&](int64_t begin, int64_t end) {
-                for (int64_t i = begin; i < end; ++i) {
-                    const Bvh::Nearest nearest = bvh.nearest(vertex(points.data(), i));
-                    squared_distances.data()[i] = nearest.squared_distance;
-                    closest.data()[i] = nearest.face;
-                }
-            });
-        },
-        "points", "vertices", "faces", "squared_distances", "closest");
     // vertices (V, 3), faces (F, 3) with F > 0.
     nb::class_<Bvh>(m, "FaceTree");
     def_function(
@@ -60,6 +45,19 @@ void bind_geometry(nb::module_& m) {
             tree.move(vertices.data(), faces.data());
         },
         "tree", "vertices", "faces");
+    // points (N, 3); squared_distances and closest (N,).
+    def_function(
+        m, "closest_faces",
+        [](const Bvh& tree, Array<const double, 2> points, Array<double, 1> squared_distances, Array<int64_t, 1> closest) {
+            parallel_for(points.size(0), 256, [&](int64_t begin, int64_t end) {
+                for (int64_t i = begin; i < end; ++i) {
+                    const Bvh::Nearest nearest = tree.nearest(vertex(points.data(), i));
+                    squared_distances.data()[i] = nearest.squared_distance;
+                    closest.data()[i] = nearest.face;
+                }
+            });
+        },
+        "tree", "points", "squared_distances", "closest");
     // again and intersecting (F,).
     def_function(
         m, "mark_intersecting_faces",

@@ -140,20 +140,15 @@ def flip_edges(
     least_cosine: float,
     rounds: int,
 ) -> int: ...
-def closest_faces(
-    *,
-    points: torch.Tensor,
-    vertices: torch.Tensor,
-    faces: torch.Tensor,
-    squared_distances: torch.Tensor,
-    closest: torch.Tensor,
-) -> None: ...
 
 class FaceTree:
     pass
 
 def face_tree(*, vertices: torch.Tensor, faces: torch.Tensor) -> FaceTree: ...
 def move_face_tree(*, tree: FaceTree, vertices: torch.Tensor, faces: torch.Tensor) -> None: ...
+def closest_faces(
+    *, tree: FaceTree, points: torch.Tensor, squared_distances: torch.Tensor, closest: torch.Tensor
+) -> None: ...
 def mark_intersecting_faces(*, tree: FaceTree, again: torch.Tensor | None, intersecting: torch.Tensor) -> None: ...
 def overlapping_boxes(*, tree: FaceTree) -> numpy.typing.NDArray[numpy.int64]: ...
 def count_crossings(

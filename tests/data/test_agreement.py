@@ -18,6 +18,7 @@ from etsplat.data.agreement import (
     unseen_share,
     unseen_vertices,
 )
+from etsplat.data.kept import keeping
 from etsplat.data.photograph import photograph
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
@@ -165,3 +166,15 @@ def test_what_colours_explain_is_not_contradicted(shift: float, counted: bool) -
     found = contradicted(looked._replace(score=torch.zeros(len(vertices))), colors)
     assert (found > 0.1) is counted
     assert found < 0.4
+
+
+def test_the_latest_surfaces_are_looked_at_once_while_a_start_is_made() -> None:
+    views, faces = photograph(MeshFile(*icosphere(2)), 32, 32), icosphere(2)[1]
+    surfaces = [icosphere(2)[0] * size for size in (1.0, 0.9, 0.8, 0.7)]
+    with keeping():
+        first = looked_at(views, surfaces[0], faces)
+        assert looked_at(views, surfaces[0], faces) is first
+        for surface in surfaces[1:]:
+            looked_at(views, surface, faces)
+        assert looked_at(views, surfaces[0], faces) is not first
+    assert looked_at(views, surfaces[0], faces) is not looked_at(views, surfaces[0], faces)

@@ -17,6 +17,7 @@ from etsplat.data.false_handles import (
     _covered,
     _cut,
     _fills,
+    _hits,
     _renumbered,
     _simpler,
     _Views,
@@ -77,9 +78,10 @@ def placed(shape: SignedDistance, views: Dataset) -> Surface:
     return views.normalization.apply(vertices), faces
 
 
-def said(score: torch.Tensor) -> _Agreement:
+def said(photos: list[Photo], vertices: torch.Tensor, faces: torch.Tensor, score: torch.Tensor) -> _Agreement:
     """That photos which see all agree so far; nothing would be contradicted too much."""
-    return _Agreement(score, torch.zeros(len(score), dtype=torch.bool), 1.0)
+    covered = _covered(_hits(photos, vertices, faces))
+    return _Agreement(score, torch.zeros(len(score), dtype=torch.bool), 1.0, covered)
 
 
 @pytest.mark.parametrize(("shape", "holes"), [(bowl, 0), (handled, 1)])
@@ -106,7 +108,7 @@ def test_a_hollow_with_an_arch_is_not_closed_over_that_photos_see_into(contradic
     places, photos = views.normalization.invert(vertices), photos_of(views)
     hollow = (places[:, [0, 2]].norm(dim=1) < 0.63) & (places[:, 1] > -0.25) & (places[:, 1] < 0.4)
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
-    agreed = said((~hollow).float())._replace(contradicted=contradicted)
+    agreed = said(photos, vertices, faces, (~hollow).float())._replace(contradicted=contradicted)
     assert (_simpler(_Views.of(photos), vertices, faces, agreed, 0.5, most) is None) == (contradicted == 0)
 
 
@@ -138,7 +140,7 @@ def test_a_small_hole_that_light_comes_through_stays_whatever_photos_say() -> No
     middle, rim = views.normalization.apply(torch.tensor([[0.74, 0, 0], [0.87, 0, 0]]))
     score = ((truth[0] - middle)[:, :2].norm(dim=1) > (rim - middle).norm()).float()
     most = silhouette_errors(photos, *truth) + torch.tensor([_LOST, _ADDED])
-    assert _simpler(_Views.of(photos), *truth, said(score), 0.5, most) is None
+    assert _simpler(_Views.of(photos), *truth, said(photos, *truth, score), 0.5, most) is None
 
 
 def perforated(places: np.ndarray) -> np.ndarray:
@@ -170,10 +172,10 @@ def test_what_one_mask_shows_through_a_surface_may_be_a_fault_of_it(masks: int, 
     surfaces = surface(perforated, 0.04), surface(plain, 0.04)
     before, after = ((views.normalization.apply(vertices), faces) for vertices, faces in surfaces)
     middle, photos = views.normalization.apply(torch.tensor([[0.5, 0.0, 0.5]])), photos_of(views)
-    through = [not bool(_covered([photo], *before)[0][speck_at(photo, middle)].any()) for photo in photos]
+    through = [not bool(_covered(_hits([photo], *before))[0][speck_at(photo, middle)].any()) for photo in photos]
     for photo in [photo for photo, seen in zip(photos, through, strict=True) if seen][:masks]:
         photo.pixels[0, 3][speck_at(photo, middle)] = 0
-    covered = [_covered(photos, *each) for each in (before, after)]
+    covered = [_covered(_hits(photos, *each)) for each in (before, after)]
     assert _fills(_Views.of(photos), before, *covered) == fills
 
 
@@ -203,7 +205,8 @@ def test_a_post_is_not_cut_where_its_plate_hides_the_gap() -> None:
     foot = (places[:, 1] + 0.36).abs() < 0.1
     foot &= (places[:, [0, 2]].norm(dim=1) - 0.35).abs() < 0.1
     most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
-    assert _simpler(_Views.of(photos), vertices, faces, said((~foot).float()), 0.5, most) is None
+    agreed = said(photos, vertices, faces, (~foot).float())
+    assert _simpler(_Views.of(photos), vertices, faces, agreed, 0.5, most) is None
 
 
 def bridged(places: np.ndarray) -> np.ndarray:
@@ -263,7 +266,7 @@ def test_a_handle_of_a_few_faces_goes_although_photos_agree_on_it(shape: SignedD
     _, views = photographed(shape)
     photos, (vertices, faces) = photos_of(views), placed(shape, views)
     assert genera(faces, len(vertices)) == [1]
-    vertices, faces = cut(photos, vertices, faces, said(torch.ones(len(vertices))))
+    vertices, faces = cut(photos, vertices, faces, said(photos, vertices, faces, torch.ones(len(vertices))))
     assert genera(faces, len(vertices)) == [holes]
 
 

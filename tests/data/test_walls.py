@@ -14,7 +14,7 @@ from etsplat.data.photograph import photograph
 from etsplat.data.same_colors import local_sameness
 from etsplat.data.through_lids import ThroughLid, _elsewhere
 from etsplat.data.visual_hull import visual_hull
-from etsplat.data.walls import _Walls, _walls, _with_level, between_plain_walls, between_walls
+from etsplat.data.walls import _may_reach, _Walls, _walls, _with_level, between_plain_walls, between_walls
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.measures import area_normals
@@ -110,6 +110,12 @@ def test_a_bail_over_the_hollow_is_none_of_its_lid() -> None:
     middle = torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=1) * (0.5 - MUG_WALL / 2)
     assert float(beyond(views.normalization.apply(middle + torch.tensor([0, 0.55, 0]))).max()) < 0
     assert float(beyond(views.normalization.apply(torch.tensor([[0.0, 0.2, 0.0]])))) > 0.2
+
+
+@pytest.mark.parametrize(("best", "may"), [(0.64, False), (0.66, True), (0.0, True), (-0.1, False)])
+def test_some_places_tell_where_walls_are_not_looked_for(best: float, may: bool) -> None:
+    """Unless nothing is known of them (0)."""
+    assert _may_reach(0.8, lambda pixels: best if pixels == 14 else min(best, 0)) == may
 
 
 def test_what_is_no_hollow_has_no_walls() -> None:

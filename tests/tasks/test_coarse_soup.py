@@ -31,13 +31,20 @@ from helpers.revolved import BOWL, CAN, MUG, VASE, line, revolved
 CONFIG = ReconstructConfig.quick().changed({"start.hull_faces": 1600})
 
 
-def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it() -> None:
-    """A vase, behind whose opening hardly a point is seen by two photos."""
+def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A vase, behind whose opening hardly a point is seen by two photos, where walls of one thickness are not found.
+
+    Of fewer faces its hull has edges longer than walls are thick: then it depends on what processors round.
+    """
+    for walls in ("between_walls", "between_plain_walls"):
+        monkeypatch.setattr(cut_hulls, walls, lambda *_, **others: None)
     vertices, faces, views = painted_pictures(*revolved(VASE))
-    lidded = open_hollows(views, *visual_hull(views, 1600))
+    lidded = open_hollows(views, *visual_hull(views, 3000))
     assert lidded.contradicted > CONTRADICTED
     told = list[Event]()
-    started = starts.make_start(None, views, CONFIG, tell=told.append)
+    started = starts.make_start(None, views, CONFIG.changed({"start.hull_faces": 3000}), tell=told.append)
     assert started.cut == "soup"
     said = "photos contradict the visual hull on (.*) % of its surface: a coarse soup is asked what is free"
     (sentence,) = [event for event in told if isinstance(event, NoteEvent)]
@@ -46,7 +53,7 @@ def test_a_hull_that_photos_contradict_is_cut_open_where_a_soup_sees_through_it(
     assert told.index(sentence) < told.index(fitted[0])
     share = re.fullmatch(said, str(sentence))
     assert share
-    assert float(share[1]) == pytest.approx(2, abs=0.2)  # it differs by what processors round
+    assert float(share[1]) == pytest.approx(2.3, abs=0.2)  # it differs by what processors round
     assert started.contradicted < 0.5 * lidded.contradicted
     closed = closed_hollows(views, (vertices, faces), (lidded.vertices, lidded.faces))
     assert closed_hollows(views, (vertices, faces), started.mesh.surface()) < 0.6 * closed

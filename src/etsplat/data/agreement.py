@@ -7,7 +7,7 @@ is known.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -62,6 +62,9 @@ _FEWEST = 5
 _WRONG, _UNUSUAL = 0.01, 1.3
 """Mean difference of colours from which photos are said to show something else than a face does, and so many times
 what it is on half of the surface: coarse faces do not show all of a texture."""
+
+_LOOKS = 3
+"""Surfaces of which it is known how they were seen: each takes a dozen bytes for each pixel of all photos."""
 
 _SPREAD = 4
 """Rounds in which differences are summed over neighbouring faces."""
@@ -166,8 +169,12 @@ def pixel_size(photos: list[Photo]) -> float:
     return float(distance / photos[0].K[0, 0])
 
 
-def first_hits(photo: Photo, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """(H, W) depth of the surface at each pixel, 0 where there is none, and (H, W) its face, else -1."""
+Hit: TypeAlias = tuple[Float[Tensor, "H W"], Int64[Tensor, "H W"]]
+"""The depth of a surface at each pixel of a photo, 0 where there is none, and its face, else -1."""
+
+
+def first_hits(photo: Photo, vertices: Tensor, faces: Tensor) -> Hit:
+    """Where a photo sees a surface first."""
     size = photo.pixels.shape[2:]
     triangle, depth = torch.empty(size, dtype=torch.int32), torch.empty(size)
     _native.rasterize_opaque(**photo.drawing(vertices, faces), triangle=triangle, barycentrics=None, depth=depth)
@@ -208,7 +215,7 @@ class Looked(NamedTuple):
     vertices: Tensor
     faces: Tensor
     topology: MeshTopology
-    hits: list[tuple[Tensor, Tensor]]
+    hits: list[Hit]
     seen: Tensor
     score: Tensor
 
@@ -222,14 +229,32 @@ def looked_at(dataset: Dataset, vertices: Float[Tensor, "V 3"], faces: Int64[Ten
         vertices: (V, 3).
         faces: (F, 3).
     """
-    photos = photos_of(dataset)
-    return None if len(photos) < 2 or len(vertices) == 0 else looked_by(photos, vertices, faces)
+    dataset = reduced(dataset)
+    photos, looks = photos_of(dataset), _looks(dataset)
+    if len(photos) < 2 or len(vertices) == 0:
+        return None
+    if (vertices, faces) not in looks:
+        for oldest in list(looks)[: 1 - _LOOKS]:
+            del looks[oldest]
+        looks[vertices, faces] = looked_by(photos, vertices, faces)
+    return looks[vertices, faces]
 
 
-def looked_by(photos: list[Photo], vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> Looked:
-    """What photos, of `photos_of`, see of a surface."""
+@kept
+def _looks(dataset: Dataset) -> dict[tuple[Tensor, Tensor], Looked]:
+    """The latest looks at surfaces: one is asked several things."""
+    return {}
+
+
+def looked_by(
+    photos: list[Photo],
+    vertices: Float[Tensor, "V 3"],
+    faces: Int64[Tensor, "F 3"],
+    hits: list[Hit] | None = None,
+) -> Looked:
+    """What photos, of `photos_of`, see of a surface; `hits` of each if they are known."""
     topology = MeshTopology.from_faces(faces, len(vertices))
-    hits = [first_hits(photo, vertices, faces) for photo in photos]
+    hits = hits or [first_hits(photo, vertices, faces) for photo in photos]
     seen = seen_by(photos, hits, vertices, pixel_size(photos))
     score = surface_agreement(photos, seen, vertices, faces, topology.edges.long())
     return Looked(photos, vertices, faces, topology, hits, seen, score)
@@ -344,9 +369,7 @@ def per_pixel(sums: Float[Tensor, "F K"], pairs: Int64[Tensor, "P 2"]) -> Float[
     return sums[:, 1:] / sums[:, :1].clamp_min(1e-30)
 
 
-def seen_by(
-    photos: list[Photo], hits: list[tuple[Tensor, Tensor]], points: Tensor, pixel: float
-) -> Bool[Tensor, "B V"]:
+def seen_by(photos: list[Photo], hits: list[Hit], points: Tensor, pixel: float) -> Bool[Tensor, "B V"]:
     """Which photos see which points of the surface (V, 3), whose pixels are so large."""
     seen = []
     for photo, (depth, _) in zip(photos, hits, strict=True):

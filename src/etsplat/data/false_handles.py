@@ -21,7 +21,16 @@ from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt, label, maximum, maximum_position
 from torch import Tensor
 
-from etsplat.data.agreement import COMPARED, Photo, contradicted_share, first_hits, looked_by, photos_of, pixel_size
+from etsplat.data.agreement import (
+    COMPARED,
+    Hit,
+    Photo,
+    contradicted_share,
+    first_hits,
+    looked_by,
+    photos_of,
+    pixel_size,
+)
 from etsplat.data.dataset import Dataset
 from etsplat.data.kept import kept
 from etsplat.data.visual_hull import without_specks
@@ -88,21 +97,21 @@ def without_false_handles(
     if len(photos) < 2:
         return vertices, faces
     views = _views_of(dataset)
-    most = silhouette_errors(photos, vertices, faces) + torch.tensor([_LOST, _ADDED])
     agreed = _Agreement.of(photos, vertices, faces)
+    most = _errors(photos, agreed.covered) + torch.tensor([_LOST, _ADDED])
     for level in _LEVELS:
         while (simpler := _simpler(views, vertices, faces, agreed, level, most)) is not None:
             vertices, faces, agreed = simpler
             if not any(genera(faces, len(vertices))):
                 return vertices, faces
-    most, tried = silhouette_errors(photos, vertices, faces) + torch.tensor([0, _BLOCKED]), None
+    most, tried = _errors(photos, agreed.covered) + torch.tensor([0, _BLOCKED]), None
     while tried is not faces:
         tried, loops = faces, short_loops(vertices, faces)
         while (found := _cut(views, vertices, faces, agreed, most, loops)) is not None:
-            vertices, faces, loops = found
+            vertices, faces, hits, loops = found
             if not any(genera(faces, len(vertices))):
                 return vertices, faces
-            agreed = _Agreement.of(photos, vertices, faces)
+            agreed = _Agreement.of(photos, vertices, faces, hits)
     return vertices, faces
 
 
@@ -143,16 +152,18 @@ class _Agreement(NamedTuple):
         score: (V,) how far they agree at its vertices, NaN where it is not known.
         hidden: (V,) which of them too few see.
         contradicted: the largest patch that they contradict (`contradicted_share`).
+        covered: of each photo, (H, W) the pixels that it covers.
     """
 
     score: Float[Tensor, " V"]
     hidden: Bool[Tensor, " V"]
     contradicted: float
+    covered: list[Bool[Tensor, "H W"]]
 
     @classmethod
-    def of(cls, photos: list[Photo], vertices: Tensor, faces: Tensor) -> "_Agreement":
-        looked = looked_by(photos, vertices, faces)
-        return cls(looked.score, looked.seen.sum(dim=0) < COMPARED, contradicted_share(looked))
+    def of(cls, photos: list[Photo], vertices: Tensor, faces: Tensor, hits: list[Hit] | None = None) -> "_Agreement":
+        looked = looked_by(photos, vertices, faces, hits)
+        return cls(looked.score, looked.seen.sum(dim=0) < COMPARED, contradicted_share(looked), _covered(looked.hits))
 
 
 @kept
@@ -162,10 +173,11 @@ def _views_of(dataset: Dataset) -> _Views:
 
 def _cut(
     views: _Views, vertices: Tensor, faces: Tensor, agreed: _Agreement, most: Tensor, loops: list[list[int]]
-) -> tuple[Tensor, Tensor, list[list[int]]] | None:
+) -> tuple[Tensor, Tensor, list[Hit], list[list[int]]] | None:
     """The surface cut along a short loop, with a smaller genus, if there is one: the shortest is tried first.
 
-    With it come those loops that were not tried and are not near the cut: to look for all anew takes long.
+    With it come where photos see it, and those loops that were not tried and are not near the cut: to look for all
+    anew takes long.
 
     Args:
         views: all that look.
@@ -175,8 +187,8 @@ def _cut(
         most: (B, 2) errors of silhouettes that are allowed.
         loops: from `short_loops`.
     """
-    before, (score, hidden, _), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
-    was, tried = None, torch.zeros(len(vertices), dtype=torch.bool)
+    before, (score, hidden, *_), least = genera(faces, len(vertices)), agreed, _smallest(faces, len(vertices))
+    tried = torch.zeros(len(vertices), dtype=torch.bool)
     for number, loop in enumerate(loops):
         if len(loop) > _THIN or 2 * int(tried[loop].sum()) > len(loop):
             continue
@@ -190,14 +202,11 @@ def _cut(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        covered = _covered_within(views.photos, *found, most)
-        if covered is None:
-            continue
-        was = was or _covered(views.photos, vertices, faces)
-        if _fills(views, (vertices, faces), was, covered):
+        hits = _hits_within(views.photos, *found, most)
+        if hits is None or _fills(views, (vertices, faces), agreed.covered, _covered(hits)):
             continue
         if doubted or not _lets_go(views, (vertices, faces), found):
-            return *found, _renumbered(loops[number + 1 :], vertices, found[0], around)
+            return *found, hits, _renumbered(loops[number + 1 :], vertices, found[0], around)
     return None
 
 
@@ -233,7 +242,7 @@ def _simpler(
     before, score, least = genera(faces, len(vertices)), agreed.score, _smallest(faces, len(vertices))
     low, unseen = score < level, score.isnan()
     edges = MeshTopology.from_faces(faces, len(vertices)).edges.long()
-    was, deep = None, _DEEP * mean_edge(vertices, edges) / pixel_size(views.photos)
+    deep = _DEEP * mean_edge(vertices, edges) / pixel_size(views.photos)
     # Of most posts photos see one side. With the other they are handles, but what is not seen may join several.
     regions = _regions(faces, low[faces].all(dim=1))
     hidden = _regions(faces, (low | unseen)[faces].all(dim=1))
@@ -242,15 +251,15 @@ def _simpler(
         after = genera(found[1], len(found[0]))
         if sum(after) >= sum(before) or len(after) != len(before):
             continue
-        covered = _covered_within(views.photos, *found, most)
-        if covered is None:
+        hits = _hits_within(views.photos, *found, most)
+        if hits is None:
             continue
-        was = was or _covered(views.photos, vertices, faces)
+        was, covered = agreed.covered, _covered(hits)
         if _closes(views.photos, was, covered, deep) or _fills(views, (vertices, faces), was, covered):
             continue
         if _lets_go(views, (vertices, faces), found):
             continue
-        now = _Agreement.of(views.photos, *found)
+        now = _Agreement.of(views.photos, *found, hits)
         if now.contradicted <= agreed.contradicted + _SPOILT:
             return *found, now
     return None
@@ -348,28 +357,29 @@ def _regions(faces: Tensor, low: Bool[Tensor, " F"]) -> list[Bool[Tensor, " F"]]
 
 def silhouette_errors(photos: list[Photo], vertices: Tensor, faces: Tensor) -> Float[Tensor, "B 2"]:
     """Of each view, the pixels that the surface should cover and does not, and the reverse, per silhouette."""
-    return _errors(photos, _covered(photos, vertices, faces))
+    return _errors(photos, _covered(_hits(photos, vertices, faces)))
 
 
-def _covered(photos: list[Photo], vertices: Tensor, faces: Tensor) -> list[Bool[Tensor, "H W"]]:
-    """Of each view, the pixels that a surface covers."""
-    return [first_hits(photo, vertices, faces)[1] >= 0 for photo in photos]
+def _hits(photos: list[Photo], vertices: Tensor, faces: Tensor) -> list[Hit]:
+    return [first_hits(photo, vertices, faces) for photo in photos]
 
 
-def _covered_within(
-    photos: list[Photo], vertices: Tensor, faces: Tensor, most: Float[Tensor, "B 2"]
-) -> list[Bool[Tensor, "H W"]] | None:
-    """As `_covered`; None where the errors of a silhouette are larger than allowed: one photo is enough to say so."""
-    covered = []
+def _covered(hits: list[Hit]) -> list[Bool[Tensor, "H W"]]:
+    return [face >= 0 for _, face in hits]
+
+
+def _hits_within(photos: list[Photo], vertices: Tensor, faces: Tensor, most: Float[Tensor, "B 2"]) -> list[Hit] | None:
+    """Where photos see a surface; None where the errors of a silhouette are larger than allowed: one is enough."""
+    hits = list[Hit]()
     for photo, limit in zip(photos, most, strict=True):
-        covered += _covered([photo], vertices, faces)
-        if bool((_errors([photo], covered[-1:]) > limit).any()):
+        hits += _hits([photo], vertices, faces)
+        if bool((_errors([photo], _covered(hits[-1:])) > limit).any()):
             return None
-    return covered
+    return hits
 
 
-def _errors(photos: list[Photo], covered: list[Tensor]) -> Float[Tensor, "B 2"]:
-    """As `silhouette_errors`, of what `_covered` found."""
+def _errors(photos: list[Photo], covered: list[Bool[Tensor, "H W"]]) -> Float[Tensor, "B 2"]:
+    """As `silhouette_errors`, of what a surface covers."""
     found = []
     for photo, drawn in zip(photos, covered, strict=True):
         alpha = photo.pixels[0, 3]

@@ -14,12 +14,13 @@ from torch import Tensor
 from etsplat import _native
 from etsplat.data.agreement import (
     AGREED,
+    Hit,
     Photo,
     agreement,
     averaged,
     contradicted_share,
     first_hits,
-    looked_by,
+    looked_at,
     photos_of,
     pixel_size,
     reduced,
@@ -146,15 +147,14 @@ def open_hollows(
         most: faces that it may have after it, if it has not more already; None for any number.
     """
     dataset = reduced(dataset)
-    photos = photos_of(dataset)
-    if len(photos) < 2 or len(vertices) == 0:
+    if len(photos_of(dataset)) < 2 or len(vertices) == 0:
         return Opened(vertices, faces, 0, 0.0, 1.0, 0.0, (vertices, faces))
     edge, half_more = float(_edge_lengths(vertices, faces).mean()), len(faces) * 3 // 2
     most = half_more if most is None else min(most, half_more)
     lidded, total, look = (vertices, faces), 0, _Look(vertices, 0, 0.0, 1.0, 0.0)
     outside = outside_hull(dataset)
     for _ in range(_PASSES):
-        look = _push(photos, outside, vertices, faces)
+        look = _push(dataset, outside, vertices, faces)
         if look.moved == 0:
             break
         total += look.moved
@@ -163,10 +163,11 @@ def open_hollows(
     return Opened(vertices, faces, total, look.contradicted, doubtful, look.agreed, lidded)
 
 
-def _push(photos: list[Photo], outside: Distance, vertices: Tensor, faces: Tensor) -> _Look:
+def _push(dataset: Dataset, outside: Distance, vertices: Tensor, faces: Tensor) -> _Look:
     """One look at all lids."""
-    looked = looked_by(photos, vertices, faces)
-    hits, score, edges = looked.hits, looked.score, looked.topology.edges.long()
+    looked = looked_at(dataset, vertices, faces)
+    assert looked is not None
+    photos, hits, score, edges = looked.photos, looked.hits, looked.score, looked.topology.edges.long()
     pixel, lid = pixel_size(photos), score < AGREED
     said = (
         contradicted_share(looked),
@@ -296,7 +297,7 @@ def _means(values: Float[Tensor, " N"], group: Int64[Tensor, " N"], count: int) 
 
 def _mistaken(
     photos: list[Photo],
-    before: list[tuple[Tensor, Tensor]],
+    before: list[Hit],
     score: Float[Tensor, " V"],
     moved: Float[Tensor, "V 3"],
     faces: Int64[Tensor, "F 3"],

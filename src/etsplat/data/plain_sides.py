@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import AGREED, Photo, first_hits, looked_at, pixel_size, reduced
+from etsplat.data.agreement import AGREED, Hit, Photo, first_hits, looked_at, pixel_size, reduced
 from etsplat.data.dataset import Dataset
 from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.films import held, tight_film
@@ -143,7 +143,7 @@ class _Outline:
 
 def _drawn_flat(
     photos: list[Photo],
-    hits: list[tuple[Tensor, Tensor]],
+    hits: list[Hit],
     vertices: Tensor,
     faces: Tensor,
     edges: Tensor,

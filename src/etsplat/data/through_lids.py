@@ -1,13 +1,17 @@
 """What photos see through a lid of a hull, if what is below it is a hollow with walls that are so thick."""
 
+import copy
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from etsplat.data.agreement import SMOOTH, Looked, agreement, averaged, first_hits, pixel_size
+from etsplat.data.pixels_of import PixelsOf
 from etsplat.data.same_colors import colors_at, sameness
-from etsplat.geometry.distance import closest_points
+from etsplat.geometry.distance import ClosestPoints
 from etsplat.geometry.measures import area_normals, mean_edge, vertex_normals
 from etsplat.geometry.topology import connected
 
@@ -19,6 +23,22 @@ _ALONE = 0.9
 
 _KNOWN, _FEWEST = 0.2, 64
 """Of the places on walls that two photos see, so many have texture, and so many there are: else it may be chance."""
+
+
+class _Seen(NamedTuple):
+    """Places on walls that are nearest there, each seen through a lid by two photos at least.
+
+    Attributes:
+        own: (N,) of which vertices.
+        places: (N, 3).
+        seen: (B, N) by which photos.
+        within: (B, N) how far from the lid's border each photo looks through it; 0 beside it.
+    """
+
+    own: Int64[Tensor, " N"]
+    places: Float[Tensor, "N 3"]
+    seen: Bool[Tensor, "B N"]
+    within: Float[Tensor, "B N"]
 
 
 class ThroughLid:
@@ -43,9 +63,23 @@ class ThroughLid:
         normals = averaged(vertex_normals(vertices, faces), edges, SMOOTH)
         self._normals, self._below = normals[self._own], normals @ self.up < -LEVEL
         self.elsewhere = _elsewhere(vertices, edges, self.lid.unique(), pushed, normals @ self.up)
-        self._of_lid, self._within = lid, torch.full((len(faces),), -torch.inf)
-        self._within[lid] = distance_from(vertices[self.lid].mean(dim=1), vertices, self.rest)
-        self._behind = [first_hits(photo, vertices, self.rest)[0][None, None] for photo in looked.photos]
+        mixed = torch.where(self._below[:, None], self.elsewhere, vertices)
+        self._surfaces = [_Surface(each, self.rest) for each in (vertices, self.elsewhere, mixed)]
+        self._within = self._surfaces[0].distance(vertices[self.lid].mean(dim=1))
+        of_faces = torch.zeros(len(faces) + 1)  # the last where there is none
+        of_faces[:-1][lid] = self._within
+        of_pixels = [of_faces[hit] for _, hit in looked.hits]
+        self._masks = [(within > 0).float()[None, None] for within in of_pixels]
+        self._pixels = PixelsOf(looked.photos)
+        self._of_pixels = self._pixels.together(of_pixels)
+        self._behind = self._pixels.together([first_hits(photo, vertices, self.rest)[0] for photo in looked.photos])
+        self._colors = dict[tuple[int, int], tuple[_Seen, Tensor]]()
+
+    def thinned(self, every: int) -> "ThroughLid":
+        """The same, asked of one in so many of the places."""
+        found = copy.copy(self)
+        found._own, found._normals, found._colors = self._own[::every], self._normals[::every], {}
+        return found
 
     def level(self, faces: Int64[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
         """Which faces look up as the lid does."""
@@ -61,15 +95,15 @@ class ThroughLid:
 
     def agreed(self, pixels: int) -> float:
         """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
-        return self._agreed(pixels * self.pixel, self.vertices, torch.ones_like(self._own, dtype=torch.bool))
+        return self._agreed(pixels, self._surfaces[0])
 
     def floor_agreed(self, pixels: int) -> float:
         """The same on a bottom so thick."""
-        return self._agreed(pixels * self.pixel, self.elsewhere, self._below[self._own])
+        return self._agreed(pixels, self._surfaces[1], self._below[self._own])
 
     def closed_sameness(self, rim: int) -> float:
         """How far each place on the lid itself has one colour, but for so much along its border."""
-        own = self.lid[self._within[self._of_lid] > rim * self.pixel].unique()
+        own = self.lid[self._within > rim * self.pixel].unique()
         return sameness(colors_at(self._photos, self.vertices[own]), self._looked.seen[:, own])
 
     def sameness(self, pixels: int, floor: int, rim: int) -> float:
@@ -77,54 +111,64 @@ class ThroughLid:
 
         So much of the lid along its border is left out: it may be the rim, which hides what is behind.
         """
-        thickness = torch.where(self._below[self._own], float(floor), float(pixels)) * self.pixel
-        vertices = torch.where(self._below[:, None], self.elsewhere, self.vertices)
-        places = vertices[self._own] - thickness[:, None] * self._normals
-        places = places[distance_from(places, vertices, self.rest) >= _ALONE * thickness]
-        seen = self._seen(places, self._masks(rim * self.pixel))
+        found, colors = self._colors_of(pixels, floor)
+        seen = found.seen & (found.within > rim * self.pixel)
         enough = seen.sum(dim=0) >= 2
-        if int(enough.sum()) < _FEWEST:
-            return 0.0
-        return sameness(colors_at(self._photos, places[enough]), seen[:, enough])
+        return sameness(colors[:, enough], seen[:, enough]) if int(enough.sum()) >= _FEWEST else 0.0
 
-    def _agreed(self, thickness: float, vertices: Float[Tensor, "V 3"], some: Bool[Tensor, " O"]) -> float:
-        places = vertices[self._own] - thickness * self._normals
-        some = some & (distance_from(places, vertices, self.rest) >= _ALONE * thickness)
-        places, normals, masks = places[some], -self._normals[some], self._masks(-torch.inf)
-        seen = self._seen(places, masks)
-        views = seen.sum(dim=0)
-        asked = views >= 2
-        if not bool(asked.any()):
+    def _colors_of(self, pixels: int, floor: int) -> tuple[_Seen, Float[Tensor, "B N 3"]]:
+        """Places on walls and bottom so thick, and their colours: asked of again with other rims."""
+        if (pixels, floor) not in self._colors:
+            thickness = torch.where(self._below[self._own], float(floor), float(pixels)) * self.pixel
+            found = self._seen(thickness, self._surfaces[2])
+            self._colors[pixels, floor] = found, colors_at(self._photos, found.places)
+        return self._colors[pixels, floor]
+
+    def _agreed(self, pixels: int, surface: "_Surface", some: Bool[Tensor, " O"] | None = None) -> float:
+        own, places, seen, _ = self._seen(torch.full((len(self._own),), pixels * self.pixel), surface, some)
+        if len(own) == 0:
             return 0.0
-        score = agreement(self._photos, masks, places[asked], normals[asked], seen[:, asked], self.pixel, fewest=2)
-        weight = torch.where(score.isnan(), 0, views[asked]).float()
+        score = agreement(self._photos, self._masks, places, -self._normals[own], seen, self.pixel, fewest=2)
+        weight = torch.where(score.isnan(), 0, seen.sum(dim=0)).float()
         known = int((weight > 0).sum())
         if known < max(_FEWEST, _KNOWN * len(score)):
             return 0.0
         return float((weight * score.nan_to_num()).sum() / weight.sum())
 
-    def _masks(self, within: float) -> list[Float[Tensor, "1 1 H W"]]:
-        """Where each photo sees the lid, farther from its border than this."""
-        lid = self._within > within
-        return [((hit >= 0) & lid[hit.clamp_min(0)]).float()[None, None] for _, hit in self._looked.hits]
+    def _seen(
+        self, thickness: Float[Tensor, " O"], surface: "_Surface", some: Bool[Tensor, " O"] | None = None
+    ) -> _Seen:
+        """Places so far within a surface that photos see through the lid, before its outer side from within."""
+        own = torch.arange(len(self._own)) if some is None else some.nonzero()[:, 0]
+        places = surface.vertices[self._own[own]] - thickness[own, None] * self._normals[own]
+        shown, z = self._pixels.show(places)
+        within, behind = self._of_pixels[shown], self._behind[shown]
+        by = (within > 0) & ((behind == 0) | (z <= behind + 0.5 * self.pixel))
+        asked = (by.sum(dim=0) >= 2).nonzero()[:, 0]
+        alone = surface.distance(places[asked]) >= _ALONE * thickness[own[asked]]
+        asked = asked[alone]
+        return _Seen(own[asked], places[asked], by[:, asked], within[:, asked])
 
-    def _seen(self, places: Float[Tensor, "N 3"], masks: list[Tensor]) -> Bool[Tensor, "B N"]:
-        """Which photos see which places through the lid, before they see the outer side of the walls from within."""
-        seen = []
-        for photo, mask, depth in zip(self._photos, masks, self._behind, strict=True):
-            place, z = photo.project(places)
-            through, behind = (photo.look_up(plane, place[None], "nearest")[0, 0] for plane in (mask, depth))
-            seen.append((through > 0.5) & ((behind == 0) | (z <= behind + 0.5 * self.pixel)))
-        return torch.stack(seen)
+
+class _Surface:
+    """Some faces with vertices (V, 3), and how far points are from them."""
+
+    def __init__(self, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> None:
+        self.vertices = vertices
+        self._closest = ClosestPoints(vertices, faces) if len(faces) > 0 else None
+
+    def distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """Infinite if there are no faces."""
+        if self._closest is None:
+            return points.new_full((len(points),), torch.inf)
+        return self._closest(points)[0].sqrt().to(points)
 
 
 def distance_from(
     points: Float[Tensor, "N 3"], vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
 ) -> Float[Tensor, " N"]:
     """Of points from some faces; infinite if there are none."""
-    if len(faces) == 0:
-        return points.new_full((len(points),), torch.inf)
-    return closest_points(points, vertices, faces)[0].sqrt().to(points)
+    return _Surface(vertices, faces).distance(points)
 
 
 def _elsewhere(

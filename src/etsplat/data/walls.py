@@ -48,6 +48,9 @@ _SAME = 0.8
 _SHEET = 0.75
 """What the sameness on walls lacks of 1 is so many times what it lacks on a sheet without thickness, at most."""
 
+_EVERY, _ROUGHLY = 4, 0.15
+"""First one in so many places is asked: where photos agree less than they must by more than that, no more are."""
+
 _CLEAR, _THICKER = 0.8, 0.1
 """Mean correlation on a bottom that is not as thick as the walls, at least; and by so much more than if it were."""
 
@@ -204,6 +207,8 @@ def _with_level(
 
 def _textured(through: ThroughLid, least: float) -> _Walls | None:
     """The walls around the hollow under a lid; None where photos correlate on none."""
+    if not _may_reach(least, through.thinned(_EVERY).agreed):
+        return None
     best, agreed = _likeliest(through.agreed)
     lowest = min([through.closed(), *(each for each in agreed.values() if each > 0)])
     if agreed[best] < max(least, lowest + _PEAK):
@@ -218,6 +223,9 @@ def _plain(through: ThroughLid) -> tuple[float, _Walls | None]:
 
     Nor are there any where texture is known and tells otherwise.
     """
+    rough = through.thinned(_EVERY)
+    if not _may_reach(_SAME, lambda pixels: rough.sameness(pixels, pixels, pixels)):
+        return 0.0, None
     rim, same = _likeliest(lambda pixels: through.sameness(pixels, pixels, pixels))
     if same[rim] < max(_SAME, through.closed_sameness(rim) + _PEAK):
         return 0.0, None
@@ -230,6 +238,12 @@ def _plain(through: ThroughLid) -> tuple[float, _Walls | None]:
     deepest, floors = _likeliest(lambda pixels: through.sameness(best, pixels, rim))
     clear = 1 - floors[deepest] <= _LESS * (1 - thinner[best])
     return thinner[best], _around(through, best, deepest if clear else best)
+
+
+def _may_reach(least: float, agreed: Callable[[int], float]) -> bool:
+    """Whether photos may agree so much at some thickness, as far as some of the places tell; if none do, they may."""
+    best = max(agreed(pixels) for pixels in _PIXELS)
+    return best == 0 or best >= least - _ROUGHLY
 
 
 def _likeliest(agreed: Callable[[int], float]) -> tuple[int, dict[int, float]]:

@@ -9,6 +9,35 @@ from etsplat.core.validation import check_shape, dense
 from etsplat.geometry.measures import native_mesh
 
 
+class ClosestPoints:
+    """A triangle mesh that is asked more than once how far points are from it; else `closest_points` does.
+
+    Args:
+        vertices: (V, 3) finite.
+        faces: (F, 3), at least one.
+
+    Raises:
+        ValueError: a shape is wrong, a coordinate is not finite, an index is out of range, or there are no faces.
+    """
+
+    def __init__(self, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> None:
+        vertices, faces = native_mesh(vertices, faces)
+        if len(faces) == 0:
+            raise ValueError("faces must not be empty")
+        self._tree = _native.face_tree(vertices=vertices, faces=faces)
+
+    def __call__(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"]]:
+        """As `closest_points`."""
+        check_shape("points", points, ("N", 3))
+        if not bool(points.isfinite().all()):
+            raise ValueError("points must be finite, got NaN or infinity")
+        points = dense(points.cpu().double(), "points")
+        squared = torch.empty(len(points), dtype=torch.float64)
+        nearest = torch.empty(len(points), dtype=torch.int64)
+        _native.closest_faces(tree=self._tree, points=points, squared_distances=squared, closest=nearest)
+        return squared, nearest
+
+
 def closest_points(
     points: Float[Tensor, "N 3"], vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"]]:
@@ -29,17 +58,7 @@ def closest_points(
     Raises:
         ValueError: a shape is wrong, a coordinate is not finite, an index is out of range, or there are no faces.
     """
-    check_shape("points", points, ("N", 3))
-    if not bool(points.isfinite().all()):
-        raise ValueError("points must be finite, got NaN or infinity")
-    points = dense(points.cpu().double(), "points")
-    vertices, faces = native_mesh(vertices, faces)
-    if len(faces) == 0:
-        raise ValueError("faces must not be empty")
-    squared = torch.empty(len(points), dtype=torch.float64)
-    nearest = torch.empty(len(points), dtype=torch.int64)
-    _native.closest_faces(points=points, vertices=vertices, faces=faces, squared_distances=squared, closest=nearest)
-    return squared, nearest
+    return ClosestPoints(vertices, faces)(points)
 
 
 def closest_places(
