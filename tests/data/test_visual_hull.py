@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import etsplat.data.visual_hull as visual_hull_module
 from etsplat.data.demo_object import demo_object
 from etsplat.data.photograph import photograph
 from etsplat.data.pictures import StoredPictures
@@ -96,6 +97,23 @@ def test_what_was_a_part_before_a_cut_is_no_speck_after_it():
     _, kept = without_specks(found, triangles, least=int(face_parts(triangles, len(found)).bincount().min()))
     assert len(kept) == len(triangles)
     assert len(without_specks(found, triangles)[1]) < len(triangles)
+
+
+def test_what_is_free_is_asked_near_the_hull_alone_and_its_surface_is_the_same(
+    object_and_views, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, _, views = object_and_views
+    asked, found = [0, 0], []
+    for turn, out in enumerate((visual_hull_module._OUT, torch.inf)):
+        monkeypatch.setattr(visual_hull_module, "_OUT", out)
+
+        def free(points: torch.Tensor, turn: int = turn) -> torch.Tensor:
+            asked[turn] += len(points)
+            return 0.3 - (points - torch.tensor([0.0, 0.8, 0.0])).norm(dim=1)
+
+        found.append(visual_hull(views, 1000, free=free))
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+    assert asked[0] < 0.5 * asked[1]
 
 
 def test_what_is_free_within_the_hull_is_no_part_of_its_surface(object_and_views):

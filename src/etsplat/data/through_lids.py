@@ -64,7 +64,7 @@ class ThroughLid:
         self._normals, self._below = normals[self._own], normals @ self.up < -LEVEL
         self.elsewhere = _elsewhere(vertices, edges, self.lid.unique(), pushed, normals @ self.up)
         mixed = torch.where(self._below[:, None], self.elsewhere, vertices)
-        self._surfaces = [_Surface(each, self.rest) for each in (vertices, self.elsewhere, mixed)]
+        self._surfaces = [Surface(each, self.rest) for each in (vertices, self.elsewhere, mixed)]
         self._within = self._surfaces[0].distance(vertices[self.lid].mean(dim=1))
         of_faces = torch.zeros(len(faces) + 1)  # the last where there is none
         of_faces[:-1][lid] = self._within
@@ -124,7 +124,7 @@ class ThroughLid:
             self._colors[pixels, floor] = found, colors_at(self._photos, found.places)
         return self._colors[pixels, floor]
 
-    def _agreed(self, pixels: int, surface: "_Surface", some: Bool[Tensor, " O"] | None = None) -> float:
+    def _agreed(self, pixels: int, surface: "Surface", some: Bool[Tensor, " O"] | None = None) -> float:
         own, places, seen, _ = self._seen(torch.full((len(self._own),), pixels * self.pixel), surface, some)
         if len(own) == 0:
             return 0.0
@@ -136,7 +136,7 @@ class ThroughLid:
         return float((weight * score.nan_to_num()).sum() / weight.sum())
 
     def _seen(
-        self, thickness: Float[Tensor, " O"], surface: "_Surface", some: Bool[Tensor, " O"] | None = None
+        self, thickness: Float[Tensor, " O"], surface: "Surface", some: Bool[Tensor, " O"] | None = None
     ) -> _Seen:
         """Places so far within a surface that photos see through the lid, before its outer side from within."""
         own = torch.arange(len(self._own)) if some is None else some.nonzero()[:, 0]
@@ -150,7 +150,7 @@ class ThroughLid:
         return _Seen(own[asked], places[asked], by[:, asked], within[:, asked])
 
 
-class _Surface:
+class Surface:
     """Some faces with vertices (V, 3), and how far points are from them."""
 
     def __init__(self, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> None:
@@ -168,7 +168,7 @@ def distance_from(
     points: Float[Tensor, "N 3"], vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]
 ) -> Float[Tensor, " N"]:
     """Of points from some faces; infinite if there are none."""
-    return _Surface(vertices, faces).distance(points)
+    return Surface(vertices, faces).distance(points)
 
 
 def _elsewhere(

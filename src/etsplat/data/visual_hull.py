@@ -44,6 +44,9 @@ _FEWEST, _APART, _PIXELS, _PHOTOS = 12, 3, 4, 3
 """But not those of so many faces, so many cells from all others, that are all that explains so many pixels in so many
 photos: a part is there, however small. Nearer ones are bits of what is too thin for the grid."""
 
+_OUT = 0.15
+"""So far outside of a hull, in units of its radius and some cells, it does not matter whether space is free."""
+
 _CHUNK = 1 << 17
 """Points that are looked up together."""
 
@@ -77,7 +80,11 @@ def visual_hull(
     outside = outside_hull(dataset)
 
     def beyond(points: Tensor) -> Tensor:
-        return outside(points) if free is None else torch.maximum(outside(points), free(points))
+        found = outside(points)
+        if free is not None:
+            near = found < _OUT
+            found[near] = torch.maximum(found[near], free(points[near]))
+        return found
 
     def distance(points: np.ndarray) -> np.ndarray:
         chunks = torch.from_numpy(points).float().split(_CHUNK)

@@ -7,7 +7,8 @@ each place has one colour.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -18,7 +19,7 @@ from etsplat.data.agreement import SMOOTH, Looked, averaged, looked_at, pixel_si
 from etsplat.data.dataset import Dataset
 from etsplat.data.passages import through_wide_passages
 from etsplat.data.same_colors import local_sameness
-from etsplat.data.through_lids import LEVEL, ThroughLid, distance_from
+from etsplat.data.through_lids import LEVEL, Surface, ThroughLid, distance_from
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.geometry.measures import area_normals, face_areas, vertex_normals
 from etsplat.geometry.topology import connected
@@ -64,7 +65,8 @@ _THICK = 1.5
 """Mean edges of the hull: thinner walls would have holes once they are meshed."""
 
 
-class _Walls(NamedTuple):
+@dataclass(frozen=True)
+class _Walls:
     """Walls around a hollow under a lid.
 
     Attributes:
@@ -90,10 +92,13 @@ class _Walls(NamedTuple):
 
         Measured from a rim, too, walls would have a brim there.
         """
-        others = (self.lid, self.rim, self.bottom, self.sides)
-        lid, rim, bottom, sides = (distance_from(points, self.vertices, faces) for faces in others)
+        lid, rim, bottom, sides = (surface.distance(points) for surface in self._surfaces)
         around = torch.minimum(bottom - self.floor, sides - self.thickness)
         return torch.where(lid < rim, around, torch.minimum(rim - self.thickness, around))
+
+    @cached_property
+    def _surfaces(self) -> list[Surface]:
+        return [Surface(self.vertices, faces) for faces in (self.lid, self.rim, self.bottom, self.sides)]
 
     def hollow(self, outside: Distance) -> Distance:
         """The same of the hollow under the lid alone, which ends at passages no wider than both walls beside them."""
