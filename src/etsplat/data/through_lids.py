@@ -41,6 +41,20 @@ class _Seen(NamedTuple):
     within: Float[Tensor, "B N"]
 
 
+class Surface:
+    """Some faces with vertices (V, 3), and how far points are from them."""
+
+    def __init__(self, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> None:
+        self.vertices = vertices
+        self._closest = ClosestPoints(vertices, faces) if len(faces) > 0 else None
+
+    def distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """Infinite if there are no faces."""
+        if self._closest is None:
+            return points.new_full((len(points),), torch.inf)
+        return self._closest(points)[0].sqrt().to(points)
+
+
 class ThroughLid:
     """What photos see through a lid.
 
@@ -63,9 +77,10 @@ class ThroughLid:
         normals = averaged(vertex_normals(vertices, faces), edges, SMOOTH)
         self._normals, self._below = normals[self._own], normals @ self.up < -LEVEL
         self.elsewhere = _elsewhere(vertices, edges, self.lid.unique(), pushed, normals @ self.up)
-        mixed = torch.where(self._below[:, None], self.elsewhere, vertices)
-        self._surfaces = [Surface(each, self.rest) for each in (vertices, self.elsewhere, mixed)]
-        self._within = self._surfaces[0].distance(vertices[self.lid].mean(dim=1))
+        bottom_pushed = torch.where(self._below[:, None], self.elsewhere, vertices)
+        placed = (Surface(each, self.rest) for each in (vertices, self.elsewhere, bottom_pushed))
+        self._hull, self._pushed, self._bottom_pushed = placed
+        self._within = self._hull.distance(vertices[self.lid].mean(dim=1))
         of_faces = torch.zeros(len(faces) + 1)  # the last where there is none
         of_faces[:-1][lid] = self._within
         of_pixels = [of_faces[hit] for _, hit in looked.hits]
@@ -95,11 +110,11 @@ class ThroughLid:
 
     def agreed(self, pixels: int) -> float:
         """Mean correlation on walls so thick, by how many photos see each place; 0 where too little is known."""
-        return self._agreed(pixels, self._surfaces[0])
+        return self._agreed(pixels, self._hull)
 
     def floor_agreed(self, pixels: int) -> float:
         """The same on a bottom so thick."""
-        return self._agreed(pixels, self._surfaces[1], self._below[self._own])
+        return self._agreed(pixels, self._pushed, self._below[self._own])
 
     def closed_sameness(self, rim: int) -> float:
         """How far each place on the lid itself has one colour, but for so much along its border."""
@@ -120,11 +135,11 @@ class ThroughLid:
         """Places on walls and bottom so thick, and their colours: asked of again with other rims."""
         if (pixels, floor) not in self._colors:
             thickness = torch.where(self._below[self._own], float(floor), float(pixels)) * self.pixel
-            found = self._seen(thickness, self._surfaces[2])
+            found = self._seen(thickness, self._bottom_pushed)
             self._colors[pixels, floor] = found, colors_at(self._photos, found.places)
         return self._colors[pixels, floor]
 
-    def _agreed(self, pixels: int, surface: "Surface", some: Bool[Tensor, " O"] | None = None) -> float:
+    def _agreed(self, pixels: int, surface: Surface, some: Bool[Tensor, " O"] | None = None) -> float:
         own, places, seen, _ = self._seen(torch.full((len(self._own),), pixels * self.pixel), surface, some)
         if len(own) == 0:
             return 0.0
@@ -135,9 +150,7 @@ class ThroughLid:
             return 0.0
         return float((weight * score.nan_to_num()).sum() / weight.sum())
 
-    def _seen(
-        self, thickness: Float[Tensor, " O"], surface: "Surface", some: Bool[Tensor, " O"] | None = None
-    ) -> _Seen:
+    def _seen(self, thickness: Float[Tensor, " O"], surface: Surface, some: Bool[Tensor, " O"] | None = None) -> _Seen:
         """Places so far within a surface that photos see through the lid, before its outer side from within."""
         own = torch.arange(len(self._own)) if some is None else some.nonzero()[:, 0]
         places = surface.vertices[self._own[own]] - thickness[own, None] * self._normals[own]
@@ -148,20 +161,6 @@ class ThroughLid:
         alone = surface.distance(places[asked]) >= _ALONE * thickness[own[asked]]
         asked = asked[alone]
         return _Seen(own[asked], places[asked], by[:, asked], within[:, asked])
-
-
-class Surface:
-    """Some faces with vertices (V, 3), and how far points are from them."""
-
-    def __init__(self, vertices: Float[Tensor, "V 3"], faces: Int64[Tensor, "F 3"]) -> None:
-        self.vertices = vertices
-        self._closest = ClosestPoints(vertices, faces) if len(faces) > 0 else None
-
-    def distance(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """Infinite if there are no faces."""
-        if self._closest is None:
-            return points.new_full((len(points),), torch.inf)
-        return self._closest(points)[0].sqrt().to(points)
 
 
 def distance_from(

@@ -45,7 +45,7 @@ _FEWEST, _APART, _PIXELS, _PHOTOS = 12, 3, 4, 3
 photos: a part is there, however small. Nearer ones are bits of what is too thin for the grid."""
 
 _OUT = 0.15
-"""So far outside of a hull, in units of its radius and some cells, it does not matter whether space is free."""
+"""So far outside of a hull, several cells of any grid, it does not matter whether space is free."""
 
 _CHUNK = 1 << 17
 """Points that are looked up together."""
