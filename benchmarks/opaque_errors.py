@@ -16,8 +16,8 @@ from torch import Tensor
 from benchmarks.opaque_mesh import fitted, start
 from benchmarks.tables import Table
 from etsplat.core.rasterization import Rasterization
-from etsplat.data.agreement import Photo
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import Photo
 from etsplat.data.pictures import as_float
 from etsplat.metrics.image import psnr
 from etsplat.model.triangle_mesh import TriangleMesh

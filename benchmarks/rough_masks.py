@@ -40,9 +40,9 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 import etsplat
 from benchmarks.starts import distance
 from etsplat.core.errors import InputError
-from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import normalize_mesh
+from etsplat.data.photos import first_hits, photos_of
 from etsplat.geometry.parts import shape_of
 from etsplat.io.mesh_files import MeshFile, load_mesh
 from etsplat.tasks.reconstruct_config import ReconstructConfig

@@ -42,8 +42,8 @@ from benchmarks.measure import native_state
 from benchmarks.prototype import Prototype
 from etsplat import _native, rasterize
 from etsplat.core.cameras import Cameras
-from etsplat.data.agreement import Photo
 from etsplat.data.demo_scene import demo_scene
+from etsplat.data.photos import Photo
 from etsplat.engines.cuda.program import Program
 from etsplat.engines.reference.rasterize import to_screen
 from etsplat.engines.threads import one_torch_thread

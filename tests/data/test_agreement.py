@@ -8,18 +8,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.agreement import (
-    Photo,
-    agreement,
-    contradicted,
-    looked_at,
-    photos_of,
-    pixel_size,
-    unseen_share,
-    unseen_vertices,
-)
+from etsplat.data.agreement import agreement, contradicted, looked_at, unseen_share, unseen_vertices
 from etsplat.data.kept import keeping
 from etsplat.data.photograph import photograph
+from etsplat.data.photos import Photo, photos_of, pixel_size
 from etsplat.engines.threads import num_threads, set_num_threads
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from etsplat.data.agreement import reduced
 from etsplat.data.close_ups import close_ups, cropped_to, object_side
 from etsplat.data.dataset import Dataset
 from etsplat.data.hull import bounding_sphere
 from etsplat.data.photograph import photograph
+from etsplat.data.photos import reduced
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile

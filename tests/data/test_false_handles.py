@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.agreement import Photo, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import (
     _ADDED,
@@ -25,6 +24,7 @@ from etsplat.data.false_handles import (
     without_false_handles,
 )
 from etsplat.data.meshing import SignedDistance, dual_contour
+from etsplat.data.photos import Photo, photos_of
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.loops import short_loops

@@ -7,19 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from etsplat.data.agreement import (
-    contradicted,
-    first_hits,
-    looked_at,
-    looked_by,
-    photos_of,
-    plain_share,
-    settled,
-)
+from etsplat.data.agreement import contradicted, looked_at, looked_by, plain_share, settled
 from etsplat.data.closed_hollows import closed_hollows
 from etsplat.data.hollows import _BEND, _TEAR, _depths, _mistaken, _where_agreed, _without_unseen, open_hollows
 from etsplat.data.meshing import dual_contour
 from etsplat.data.photograph import photograph
+from etsplat.data.photos import first_hits, photos_of
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.distance import closest_points
 from etsplat.geometry.measures import face_areas

@@ -7,10 +7,11 @@ import torch
 
 from etsplat import _native
 from etsplat.core.cameras import Cameras
-from etsplat.data.agreement import differences, first_hits, per_pixel, photos_of
+from etsplat.data.agreement import differences, per_pixel
 from etsplat.data.dataset import Dataset
 from etsplat.data.lids import _without_gaps, lids, without_lids
 from etsplat.data.photograph import photograph, shade_faces
+from etsplat.data.photos import first_hits, photos_of
 from etsplat.data.pictures import StoredPictures
 from etsplat.geometry.icosphere import icosphere
 from etsplat.geometry.topology import MeshTopology

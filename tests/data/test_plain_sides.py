@@ -8,8 +8,8 @@ import torch
 from torch.nn.functional import max_pool2d
 
 from etsplat.core.cameras import camera_centers
-from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.false_handles import silhouette_errors
+from etsplat.data.photos import first_hits, photos_of
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.visual_hull import outside_hull, visual_hull
 from etsplat.geometry.distance import closest_points

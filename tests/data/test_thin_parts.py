@@ -7,10 +7,10 @@ import pytest
 import torch
 import trimesh
 
-from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors
 from etsplat.data.photograph import photograph
+from etsplat.data.photos import photos_of
 from etsplat.data.thin_parts import ThinParts
 from etsplat.data.visual_hull import visual_hull
 from etsplat.geometry.parts import Shape, shape_of

@@ -8,9 +8,10 @@ import torch
 import trimesh
 from torch.nn.functional import normalize
 
-from etsplat.data.agreement import looked_at, pixel_size
+from etsplat.data.agreement import looked_at
 from etsplat.data.hollows import open_hollows
 from etsplat.data.photograph import photograph
+from etsplat.data.photos import pixel_size
 from etsplat.data.same_colors import local_sameness
 from etsplat.data.through_lids import ThroughLid, _elsewhere
 from etsplat.data.visual_hull import visual_hull

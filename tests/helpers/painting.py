@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.photograph import orbit_cameras, photograph
+from etsplat.data.photos import first_hits, photos_of
 from etsplat.data.pictures import StoredPictures
 from etsplat.io.mesh_files import MeshFile
 from etsplat.ops.rasterize_opaque import render_opaque

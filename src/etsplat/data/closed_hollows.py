@@ -9,8 +9,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import first_hits, photos_of
 
 _DEEPER = 0.2
 """So much deeper, in units of the ball around the object: grooves whose bottoms are rounded are less."""

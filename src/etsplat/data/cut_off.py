@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import reduced
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import reduced
 from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.measures import face_areas, vertex_normals
 

@@ -21,18 +21,10 @@ from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import distance_transform_edt, label, maximum, maximum_position
 from torch import Tensor
 
-from etsplat.data.agreement import (
-    COMPARED,
-    Hit,
-    Photo,
-    contradicted_share,
-    first_hits,
-    looked_by,
-    photos_of,
-    pixel_size,
-)
+from etsplat.data.agreement import COMPARED, contradicted_share, looked_by
 from etsplat.data.dataset import Dataset
 from etsplat.data.kept import kept
+from etsplat.data.photos import Hit, Photo, first_hits, photos_of, pixel_size
 from etsplat.data.visual_hull import without_specks
 from etsplat.geometry.discs import with_discs
 from etsplat.geometry.loops import short_loops

@@ -12,22 +12,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.data.agreement import (
-    AGREED,
-    Hit,
-    Photo,
-    agreement,
-    averaged,
-    contradicted_share,
-    first_hits,
-    looked_at,
-    photos_of,
-    pixel_size,
-    reduced,
-    seen_by,
-    surface_agreement,
-)
+from etsplat.data.agreement import AGREED, agreement, averaged, contradicted_share, looked_at, surface_agreement
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import Hit, Photo, first_hits, photos_of, pixel_size, reduced, seen_by
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.geometry.measures import mean_edge, vertex_normals
 from etsplat.geometry.subdivision import longest_edge_plan

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from etsplat import _native
-from etsplat.data.agreement import Photo, differences, first_hits, per_pixel, photos_of
+from etsplat.data.agreement import differences, per_pixel
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import Photo, first_hits, photos_of
 from etsplat.geometry.discs import cut_open
 from etsplat.geometry.measures import face_areas
 from etsplat.geometry.topology import MeshTopology, connected

@@ -18,8 +18,8 @@ from scipy.sparse import coo_array, csc_array, diags_array, identity
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
-from etsplat.data.agreement import Photo, first_hits
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import Photo, first_hits
 from etsplat.data.pictures import as_float
 from etsplat.geometry.laplacians import laplacian, solver
 from etsplat.geometry.measures import vertex_normals

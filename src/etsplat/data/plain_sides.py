@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import AGREED, Hit, Photo, first_hits, looked_at, pixel_size, reduced
+from etsplat.data.agreement import AGREED, looked_at
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import Hit, Photo, first_hits, pixel_size, reduced
 from etsplat.data.silhouettes import Silhouette
 from etsplat.geometry.films import held, tight_film
 from etsplat.geometry.measures import mean_edge, vertex_normals

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from etsplat.data.agreement import COMPARED, SMOOTH, Looked, Photo, averaged, largest_patch, witnesses
+from etsplat.data.agreement import COMPARED, SMOOTH, Looked, averaged, largest_patch, witnesses
+from etsplat.data.photos import Photo
 from etsplat.geometry.measures import vertex_normals
 
 _SLANT = 0.3

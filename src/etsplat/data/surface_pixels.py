@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from etsplat.data.agreement import blank_photos, first_hits
 from etsplat.data.dataset import Dataset
+from etsplat.data.photos import blank_photos, first_hits
 
 
 @torch.no_grad()

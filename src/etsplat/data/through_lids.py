@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from etsplat.data.agreement import SMOOTH, Looked, agreement, averaged, first_hits, pixel_size
-from etsplat.data.pixels_of import PixelsOf
+from etsplat.data.agreement import SMOOTH, Looked, agreement, averaged
+from etsplat.data.photos import PixelsOf, first_hits, pixel_size
 from etsplat.data.same_colors import colors_at, sameness
 from etsplat.geometry.distance import ClosestPoints
 from etsplat.geometry.measures import area_normals, mean_edge, vertex_normals

@@ -14,11 +14,11 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from etsplat.data.agreement import first_hits, photos_of
 from etsplat.data.carving import Carving
 from etsplat.data.dataset import Dataset
 from etsplat.data.kept import kept
 from etsplat.data.meshing import dual_contour
+from etsplat.data.photos import first_hits, photos_of
 from etsplat.data.silhouettes import Silhouette
 from etsplat.data.thin_parts import ThinParts
 from etsplat.geometry.manifold import taken_apart

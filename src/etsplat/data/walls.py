@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from etsplat.data.agreement import SMOOTH, Looked, averaged, looked_at, pixel_size
+from etsplat.data.agreement import SMOOTH, Looked, averaged, looked_at
 from etsplat.data.dataset import Dataset
 from etsplat.data.passages import through_wide_passages
+from etsplat.data.photos import pixel_size
 from etsplat.data.same_colors import local_sameness
 from etsplat.data.through_lids import LEVEL, Surface, ThroughLid, distance_from
 from etsplat.data.visual_hull import Distance, outside_hull

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from etsplat.data.agreement import reduced
 from etsplat.data.dataset import Dataset
 from etsplat.data.free_space import free_space
+from etsplat.data.photos import reduced
 from etsplat.data.visual_hull import Distance, outside_hull
 from etsplat.model.triangle_soup import TriangleSoup
 from etsplat.optim.loop import Event, StageEvent, StepEvent

@@ -7,11 +7,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from etsplat.data.agreement import Looked, looked_at, mean_agreement, photos_of
+from etsplat.data.agreement import Looked, looked_at, mean_agreement
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import without_false_handles
 from etsplat.data.hollows import Opened, open_hollows
 from etsplat.data.lids import without_lids
+from etsplat.data.photos import photos_of
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.same_colors import differing_share, surface_sameness
 from etsplat.data.visual_hull import Distance, visual_hull

@@ -7,9 +7,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from etsplat.core.errors import InputError
-from etsplat.data.agreement import Photo, first_hits, photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors
+from etsplat.data.photos import Photo, first_hits, photos_of
 from etsplat.data.visual_hull import NEAR, visual_hull
 from etsplat.geometry.parts import Shape, shape_of
 from etsplat.tasks.reconstruct_config import ReconstructConfig

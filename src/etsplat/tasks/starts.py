@@ -8,11 +8,11 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from etsplat.data.agreement import photos_of
 from etsplat.data.dataset import Dataset
 from etsplat.data.false_handles import silhouette_errors
 from etsplat.data.hollows import Opened
 from etsplat.data.kept import keeping
+from etsplat.data.photos import photos_of
 from etsplat.data.plain_sides import with_flat_sides
 from etsplat.data.silhouettes import silhouette, touches_border
 from etsplat.data.visual_hull import visual_hull

@@ -1,12 +1,11 @@
-"""Pixels of all photos at once, against one photo after another."""
+"""Photos that look at an object: pixels of all at once, against one after another."""
 
 from dataclasses import replace
 
 import torch
 
-from etsplat.data.agreement import Photo, photos_of
 from etsplat.data.photograph import photograph
-from etsplat.data.pixels_of import PixelsOf
+from etsplat.data.photos import Photo, PixelsOf, photos_of
 from etsplat.geometry.icosphere import icosphere
 from etsplat.io.mesh_files import MeshFile
 
