@@ -50,6 +50,23 @@ def test_a_written_face_has_its_mean_over_the_directions_in_front_of_it(degree: 
     torch.testing.assert_close(mesh.display_colors[7], mean, atol=2e-3, rtol=0)
 
 
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_opaque_faces_are_drawn_in_the_colours_that_are_written(degree: int, rng: torch.Generator) -> None:
+    """From every side, and gradients reach the constant part."""
+    mesh = ball(degree)
+    assert mesh.harmonics is not None
+    mesh.harmonics.data[:] = 0.05 * torch.randn(mesh.harmonics.shape, generator=rng)
+    mesh.colors.data[:] = 0.3 + 0.4 * mesh.colors.data
+    plain = TriangleMesh.from_mesh(VERTICES, FACES, colors=mesh.display_colors, opacity=None, sigma=None)
+    mesh.appearance = plain.appearance
+    views = cameras(torch.tensor([[0.0, 0, 3], [2, 1, -2]]))
+    drawn = mesh.render(views).color
+    torch.testing.assert_close(drawn, plain.render(views).color, atol=2e-6, rtol=0)
+    drawn.square().sum().backward()
+    assert mesh.colors.grad is not None
+    assert bool((mesh.colors.grad != 0).any())
+
+
 def test_gradients_reach_the_harmonics_and_subdivision_hands_them_on() -> None:
     """They are parameters with a row for each face."""
     mesh = ball(2)

@@ -234,6 +234,15 @@ def test_a_hull_that_is_near_all_over_takes_the_fewer_iterations() -> None:
     assert within_need(best.changed({"drawing.opaque_from": 0.5}), near)[0].drawing.opaque_from == 0.5
 
 
+@pytest.mark.parametrize("degree", [0, 2])
+def test_colours_by_direction_are_no_matter_of_how_near_a_hull_is(degree: int) -> None:
+    """Triangles become opaque sooner, with harmonics too."""
+    quick, (vertices, faces) = ReconstructConfig.quick().changed({"drawing.harmonics": degree}), icosphere(1)
+    mesh = TriangleMesh.from_mesh(vertices, faces, colors=0.5, opacity=0.98, sigma=0.25, harmonics=degree)
+    near = Started(mesh, "hull", Opened(vertices, faces, 0, CONTRADICTED, 0.05, 0.5))
+    assert within_need(quick, near)[0].drawing.opaque_from == 0.8
+
+
 def test_a_hull_that_was_cut_out_between_walls_moves_slowly_in_all_iterations() -> None:
     """Flaps that noise throws from the rim over a dark hollow stay there; what a soup cut has a way to go."""
     quick, (vertices, faces) = ReconstructConfig.quick(), icosphere(1)

@@ -47,7 +47,7 @@ def sameness(colors: Float[Tensor, "B N 3"], seen: Bool[Tensor, "B N"]) -> float
 def local_sameness(looked: Looked) -> Float[Tensor, " V"]:
     """The same around each vertex of a surface; NaN where too few photos see it, or all there is plain."""
     edges = looked.topology.edges.long()
-    moments = _moments(colors_at(looked.photos, looked.vertices), _squarely(looked), COMPARED)
+    moments = _moments(colors_at(looked.photos, looked.vertices), squarely(looked), COMPARED)
     source, target = torch.cat([edges, edges.flip(1)]).T
     for _ in range(_AROUND):
         moments = moments.index_add(0, target, moments[source]) / 4
@@ -57,7 +57,7 @@ def local_sameness(looked: Looked) -> Float[Tensor, " V"]:
 @torch.no_grad()
 def surface_sameness(looked: Looked) -> float:
     """The same of all of a surface."""
-    return sameness(colors_at(looked.photos, looked.vertices), _squarely(looked))
+    return sameness(colors_at(looked.photos, looked.vertices), squarely(looked))
 
 
 @torch.no_grad()
@@ -76,7 +76,7 @@ def _within_outline(photo: Photo) -> Float[Tensor, "1 1 H W"]:
     return 1 - max_pool2d((photo.pixels[:, 3:] < 0.95).float(), 3, stride=1, padding=1)
 
 
-def _squarely(looked: Looked) -> Bool[Tensor, "B V"]:
+def squarely(looked: Looked) -> Bool[Tensor, "B V"]:
     """Which photos see which vertices within its outline, and not at a slant."""
     vertices, edges = looked.vertices, looked.topology.edges.long()
     normals = averaged(vertex_normals(vertices, looked.faces), edges, SMOOTH)

@@ -237,7 +237,7 @@ class TriangleMesh(Model):
             return draw(
                 self.vertices,
                 connectivity=self.topology.connectivity,
-                **self.named(self.colors),
+                **self.named(self._colors_in_front()),
                 cameras=cameras,
                 backgrounds=backgrounds,
             )
@@ -335,13 +335,7 @@ class TriangleMesh(Model):
 
         Where colours depend on the direction, each face's mean over the directions in front of it.
         """
-        if self.harmonics is None:
-            return self.colors.detach().clamp(0.0, 1.0)
-        normals = area_normals(self.vertices.detach(), self.faces)
-        parts = [part for band, part in enumerate(_SEEN_FROM_FRONT, 1) for _ in range(2 * band + 1)]
-        weights = normals.new_tensor(parts[: self.harmonics.shape[1]])[:, None]
-        coefficients = torch.cat([self._constant_band(), weights * self.harmonics], dim=1).detach()
-        return spherical_harmonics(coefficients, -normals, self.degree).clamp(0.0, 1.0)
+        return self._colors_in_front().detach().clamp(0.0, 1.0)
 
     @property
     def display_face_colors(self) -> Float[Tensor, "F 3"]:
@@ -352,6 +346,16 @@ class TriangleMesh(Model):
     def degree(self) -> int:
         """Of the harmonics; 0 where there are none."""
         return 0 if self.harmonics is None else math.isqrt(self.harmonics.shape[1] + 1) - 1
+
+    def _colors_in_front(self) -> Float[Tensor, "F 3"] | Float[Tensor, "V 3"]:
+        """`display_colors` before they are clamped, differentiable but for the normals."""
+        if self.harmonics is None:
+            return self.colors
+        normals = area_normals(self.vertices.detach(), self.faces)
+        parts = [part for band, part in enumerate(_SEEN_FROM_FRONT, 1) for _ in range(2 * band + 1)]
+        weights = normals.new_tensor(parts[: self.harmonics.shape[1]])[:, None]
+        coefficients = torch.cat([self._constant_band(), weights * self.harmonics], dim=1)
+        return spherical_harmonics(coefficients, -normals, self.degree)
 
     def _constant_band(self) -> Float[Tensor, "F 1 3"]:
         return ((self.colors - 0.5) / SH_CONSTANT)[:, None]

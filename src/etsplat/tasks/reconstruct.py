@@ -74,6 +74,11 @@ _CUT: dict[Cut | None, str] = {
 }
 """What is said of a hull by `Started.cut`."""
 
+_BY_DIRECTION = (
+    "colours of the photos follow the direction (they deviate by {:.3f}): harmonics of degree {} explain that while "
+    "triangles are soft (drawing.harmonics)"
+)
+
 
 @dataclass(frozen=True)
 class ReconstructResult(Result):
@@ -187,7 +192,7 @@ def reconstruct(
             supersampling=config.pictures.supersampling,
             lpips=load_lpips(config.output.lpips_weights, job.device),
         )
-        started = make_start(start, views, config, job.device, job.announce)
+        started = make_start(start, views, config, job.device, job.announce, one_color=truth is not None)
         mesh, begun = started.mesh, started.kind
         judging = partial(_judge, scorer, views, truth, config, started, shape_of(*mesh.surface()))
         if begun == "hull":
@@ -196,6 +201,8 @@ def reconstruct(
             hull = f"the visual hull{_CUT[started.cut]}, {mesh.count:,} faces"
             job.announce(NoteEvent(f"start: {hull}; {form}"))
             config = nearby(config)
+        if started.deviation is not None and mesh.degree:
+            job.announce(NoteEvent(_BY_DIRECTION.format(started.deviation, mesh.degree)))
         config = _told(job, *within_need(config, started))
         config = _told(job, *within_pixels(config, views, mesh))
         trust = _trusted_depths(views, config, begun, job)

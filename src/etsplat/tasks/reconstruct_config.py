@@ -32,19 +32,16 @@ _SPHERE = Only("with start.shape sphere or auto", lambda config: config.start.sh
 _LARGE = Only("with vertex_update large-steps", lambda config: config.optimizer.vertex_update == "large-steps")
 _LEARNED = Only("where softness is learned", lambda config: config.soft and not config.optimizer.sigma_final)
 _EDGES = Only("with lambda_edge", lambda config: config.regularization.lambda_edge > 0)
-_FACE_COLORED = Only(
-    "with soft triangles that have a colour for each face", lambda config: config.soft and not config.vertex_colored
-)
-_PLAIN = Only("with soft triangles and harmonics 0", lambda config: config.may_end_opaque)
+_FACE_COLORED = Only("with soft triangles that have a colour for each face", lambda config: config.face_colored)
 _OPAQUE = Only(
-    "with drawing.opaque_from below 1, soft triangles and harmonics 0",
-    lambda config: config.may_end_opaque and config.drawing.opaque_from < 1,
+    "with drawing.opaque_from below 1 and soft triangles",
+    lambda config: config.soft and config.drawing.opaque_from < 1,
 )
 _OUTLINED = Only(
-    "with drawing.opaque_from below 1, soft triangles, harmonics 0 and refine_cameras off",
+    "with drawing.opaque_from below 1, soft triangles and refine_cameras off",
     lambda config: _OPAQUE.holds(config) and config.refine_cameras == "off",
 )
-_HARMONICS = Only("with harmonics", lambda config: config.drawing.harmonics > 0)
+_HARMONICS = Only("with harmonics", lambda config: config.face_colored and config.drawing.harmonics != 0)
 _UNTANGLED = Only("with untanglings", lambda config: config.refinement.untanglings > 0)
 _SUBDIVIDED = Only("with subdivisions", lambda config: config.refinement.subdivisions > 0)
 _TEXTURED = Only("with a texture", lambda config: config.texture is not None)
@@ -70,12 +67,15 @@ class Drawing:
     """Colours of soft triangles: one for each face, or one for each vertex, interpolated between."""
     distance: Annotated[Literal["barycentric", "sdf"], _SOFT] = "barycentric"
     """How far a pixel is from a soft triangle: by barycentric coordinates or by signed distance."""
-    harmonics: Annotated[int, Range(0, 3), _FACE_COLORED] = 0
-    """Degree of the harmonics by which colours of faces depend on the direction, as gloss does; 0 for none.
+    harmonics: Annotated[int | None, Range(0, 3), _FACE_COLORED] = None
+    """Degree of the harmonics by which colours of faces depend on the direction while triangles are soft; 0 for none.
+    Without them a shape is bent to explain gloss, or light that moves with the camera.
+    None for 2 where photos show the start in colours that follow the direction, else 0.
     Meshes that are written carry each face's mean over the directions in front of it."""
-    opaque_from: Annotated[float, Range(0, 1), _PLAIN] = 0.9
-    """From this fraction of a run on soft triangles with `harmonics` 0 are drawn as a viewer draws a mesh:
-    opaque, with antialiased silhouettes, which place outlines nearer to those of the photos. 1 for never.
+    opaque_from: Annotated[float, Range(0, 1), _SOFT] = 0.9
+    """From this fraction of a run on soft triangles are drawn as a viewer draws a mesh: opaque, in colours that
+    are the same from all sides, with antialiased silhouettes, which place outlines nearer to those of the photos.
+    1 for never.
     Where the hull that a run starts from is near the surface all over, from 0.8 on if that is less."""
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
     """Whose rasterizer the raster methods use; nvdiffrast must be installed and wants a CUDA device."""
@@ -328,14 +328,14 @@ class ReconstructConfig(Settings):
         return not self.method.startswith("raster-")
 
     @property
-    def may_end_opaque(self) -> bool:
-        """Whether triangles are soft and may become opaque, which have no colours that depend on the direction."""
-        return self.soft and not self.drawing.harmonics
-
-    @property
     def vertex_colored(self) -> bool:
         """Whether colours belong to vertices."""
         return self.drawing.colors == "vertex" if self.soft else self.method == "raster-vertex"
+
+    @property
+    def face_colored(self) -> bool:
+        """Whether triangles are soft and have a colour each."""
+        return self.soft and not self.vertex_colored
 
     @classmethod
     def implied_by(cls, *labels: str) -> Mapping[str, Any]:
@@ -366,6 +366,7 @@ _PAPER: dict[str, Any] = {
     "start.near_iterations": None,
     "pictures.coarse_levels": 0,
     "pictures.coarse_until": 0.5,
+    "drawing.harmonics": 0,
     "drawing.opaque_from": 1.0,
     "regularization.final": 0.0,
     "regularization.depth": "off",

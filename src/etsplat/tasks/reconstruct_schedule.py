@@ -28,7 +28,7 @@ def held_from(config: ReconstructConfig) -> int:
 def soft_until(config: ReconstructConfig) -> int:
     """The last iteration whose pictures are of soft triangles, if that comes before the last of the run, or NEVER."""
     last = round(config.drawing.opaque_from * config.iterations)
-    return last if config.may_end_opaque and last < config.iterations else NEVER
+    return last if config.soft and last < config.iterations else NEVER
 
 
 def outlines_after(config: ReconstructConfig) -> int:
@@ -85,7 +85,7 @@ def make_schedule(config: ReconstructConfig, appearance: MeshAppearance, *, near
             "colors": lambda iteration: rates.lr_colors * at_last(iteration),
             "opacity_logits": while_soft(rates.lr_opacities, soft),
             "log_sigma": 0.0 if annealed else while_soft(rates.lr_sigma, soft),
-            "harmonics": rates.lr_harmonics,
+            "harmonics": while_soft(rates.lr_harmonics, soft),
         },
         values={"log_sigma": log_sigma} if annealed else {},
         appearance=lambda iteration: appearance if iteration <= soft else opaque,
