@@ -68,14 +68,13 @@ class Drawing:
     distance: Annotated[Literal["barycentric", "sdf"], _SOFT] = "barycentric"
     """How far a pixel is from a soft triangle: by barycentric coordinates or by signed distance."""
     harmonics: Annotated[int | None, Range(0, 3), _FACE_COLORED] = None
-    """Degree of the harmonics by which colours of faces depend on the direction while triangles are soft; 0 for none.
-    Without them a shape is bent to explain gloss, or light that moves with the camera.
+    """Degree of the harmonics by which colours of faces depend on the direction while triangles are soft.
+    0 for none: then the shape is bent to explain gloss, or light that moves with the camera.
     None for 2 where photos show the start in colours that follow the direction, else 0.
     Meshes that are written carry each face's mean over the directions in front of it."""
     opaque_from: Annotated[float, Range(0, 1), _SOFT] = 0.9
-    """From this fraction of a run on soft triangles are drawn as a viewer draws a mesh: opaque, in colours that
-    are the same from all sides, with antialiased silhouettes, which place outlines nearer to those of the photos.
-    1 for never.
+    """From this fraction of a run on soft triangles are drawn as a viewer draws a mesh; 1 for never.
+    Opaque, in one colour from all sides, and antialiased: outlines come nearer to those of the photos.
     Where the hull that a run starts from is near the surface all over, from 0.8 on if that is less."""
     backend: Literal["etsplat", "nvdiffrast"] = "etsplat"
     """Whose rasterizer the raster methods use; nvdiffrast must be installed and wants a CUDA device."""
@@ -382,6 +381,7 @@ _QUICK: dict[str, Any] = {
     "max_faces": 25_000,
     "optimizer.lr_vertices": 1e-2,
     "optimizer.lr_opaque": 3e-4,
+    "optimizer.lr_harmonics": 2e-3,
     "optimizer.lr_sigma": 3e-4,
     "regularization.hold": 50,
     "refinement.subdivisions": 10,
