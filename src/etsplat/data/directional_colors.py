@@ -76,8 +76,7 @@ def _explained(
     colors, basis = _without_means(colors, weights, dim=0).double(), (weights * basis).double()
     count, numbers = weights.sum(dim=0).double(), basis.shape[2]
     normal = torch.einsum("bnk,bnl->nkl", basis, basis) + 1e-3 * torch.eye(numbers, dtype=torch.float64)
-    fitted = torch.einsum(
-        "bnk,nkc->bnc", basis, torch.linalg.solve(normal, torch.einsum("bnk,bnc->nkc", basis, colors))
-    )
+    best = torch.linalg.solve(normal, torch.einsum("bnk,bnc->nkc", basis, colors))
+    fitted = torch.einsum("bnk,nkc->bnc", basis, best)
     total, left = colors.square().sum(dim=0), (colors - fitted).square().sum(dim=0)
     return (total / (count - 1) - left / (count - numbers)).mean(dim=1)

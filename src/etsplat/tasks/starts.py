@@ -47,10 +47,9 @@ _BESIDE, _OTHER_SIZE = 1.0, 4.0
 """A given mesh is doubted that is farther from the object than that, in radii of the larger one, or so many times as
 large or small: of half the diagonal of its box."""
 
-
 _DEGREE, _DEVIATES = 2, 0.026
 """Degree of the harmonics where colours that follow the direction deviate by more. In six objects before plain
-backgrounds, glossy ones too, they do by 0.011 to 0.021, in photos of five real ones by 0.032 to 0.054."""
+backgrounds, glossy ones too, they do by 0.011 to 0.021, in photos of four real ones by 0.032 to 0.051."""
 
 
 class Started(NamedTuple):
