@@ -64,6 +64,7 @@ def fitting(views: Dataset, engine: str, config: ReconstructConfig = CONFIG, dev
         },
         {"optimizer.vertex_update": "large-steps"},
         {"drawing.opaque_from": 0.5},
+        {"drawing.harmonics": 2, "drawing.opaque_from": 0.5},
     ],
     ids=lambda settings: next(iter(settings.values())),
 )

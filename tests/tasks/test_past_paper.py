@@ -212,6 +212,14 @@ def test_a_mesh_is_opaque_at_last_and_its_outline_comes_nearer() -> None:
         assert float(mesh.render_opaque(views.cameras[index])[..., 3].sum()) == pytest.approx(wanted, rel=0.03)
 
 
+def test_triangles_may_be_opaque_from_the_first_step_on() -> None:
+    mesh, views = _small_ball()
+    vertices = mesh.vertices.detach().clone()
+    make_trainer(mesh, views, SHORT.changed({"drawing.opaque_from": 0.0, "iterations": 4})).fit(4)
+    assert mesh.appearance.kernel is None
+    assert not torch.equal(mesh.vertices, vertices)
+
+
 def test_harmonics_rest_once_triangles_are_opaque() -> None:
     """These have no colours that depend on the direction: what is learned is what is written."""
     mesh, views = _small_ball(harmonics=2)

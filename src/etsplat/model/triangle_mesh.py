@@ -39,6 +39,9 @@ _SEEN_FROM_FRONT = (2 / 3, 1 / 4, 0.0)
 """Bands 1 to 3, averaged over the directions in front of a face, each with the area that the face shows there: these
 parts of their values towards its normal (a clamped cosine in harmonics; Ramamoorthi and Hanrahan 2001)."""
 
+_LIFT = 4.0
+"""Added to colours while harmonics are evaluated, which are not below 0."""
+
 
 @dataclass(frozen=True)
 class MeshAppearance(Appearance):
@@ -348,14 +351,18 @@ class TriangleMesh(Model):
         return 0 if self.harmonics is None else math.isqrt(self.harmonics.shape[1] + 1) - 1
 
     def _colors_in_front(self) -> Float[Tensor, "F 3"] | Float[Tensor, "V 3"]:
-        """`display_colors` before they are clamped, differentiable but for the normals."""
-        if self.harmonics is None:
-            return self.colors
-        normals = area_normals(self.vertices.detach(), self.faces)
-        parts = [part for band, part in enumerate(_SEEN_FROM_FRONT, 1) for _ in range(2 * band + 1)]
-        weights = normals.new_tensor(parts[: self.harmonics.shape[1]])[:, None]
-        coefficients = torch.cat([self._constant_band(), weights * self.harmonics], dim=1)
-        return spherical_harmonics(coefficients, -normals, self.degree)
+        """`display_colors` before they are clamped; gradients reach what is the same from all sides."""
+        return self.colors if self.harmonics is None else self.colors + self._harmonics_in_front(self.harmonics)
+
+    @torch.no_grad()
+    def _harmonics_in_front(self, harmonics: Float[Tensor, "F R 3"]) -> Float[Tensor, "F 3"]:
+        """What harmonics add to a face's colour, in the mean over the directions in front of it."""
+        normals = area_normals(self.vertices, self.faces)
+        # Filled on the device: within a captured step nothing may be copied there.
+        parts = torch.cat([normals.new_full((2 * band + 1, 1), part) for band, part in enumerate(_SEEN_FROM_FRONT, 1)])
+        lifted = normals.new_full((len(normals), 1, 3), (_LIFT - 0.5) / SH_CONSTANT)
+        coefficients = torch.cat([lifted, parts[: harmonics.shape[1]] * harmonics], dim=1)
+        return spherical_harmonics(coefficients, -normals, self.degree) - _LIFT
 
     def _constant_band(self) -> Float[Tensor, "F 1 3"]:
         return ((self.colors - 0.5) / SH_CONSTANT)[:, None]
