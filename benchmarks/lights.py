@@ -1,11 +1,11 @@
 """Meshes in light that colours of their surfaces cannot explain, and what harmonics do for their shape.
 
-    python -m benchmarks.lights FOLDER --out RUNS [--objects NAMES] [--kinds NAMES] [--harmonics auto 0 2]
+    python -m benchmarks.lights FOLDER --out RUNS [--objects NAMES] [--kinds NAMES] [--harmonics auto 0 2] [--rate R]
 
 Photographs each mesh of a folder as preset quick photographs a mesh, painted with waves, and reconstructs it with
 preset quick. Of each run it is printed: how far colours follow the direction (`directional_deviation` of the start),
 exact Chamfer distance x 1e-3 of 20,000 samples, mean angle between the normals of nearest points in degrees, silhouette
-IoU, PSNR of the mesh and CPU seconds. Kinds:
+IoU, PSNR of the mesh and CPU seconds. Harmonics are learned at the rate R, or at the preset's. Kinds:
 
     fixed    two soft lights that stay where they are, no gloss: colours are of the surface
     flash    the light is at the camera
@@ -97,11 +97,13 @@ def angle(found: MeshFile, truth: MeshFile) -> float:
     return float((angles * weights).sum() / weights.sum() * 180 / torch.pi)
 
 
-def run(mesh: MeshFile, views: Dataset, harmonics: str, out: Path) -> tuple[str, ...]:
+def run(mesh: MeshFile, views: Dataset, harmonics: str, rate: float | None, out: Path) -> tuple[str, ...]:
     """A row of the table."""
     config = ReconstructConfig.quick()
     if harmonics != "auto":
         config = config.changed({"drawing.harmonics": int(harmonics)})
+    if rate is not None and harmonics != "0":
+        config = config.changed({"optimizer.lr_harmonics": rate})
     begun = time.process_time()
     result = etsplat.reconstruct(views, out, config, overwrite=True)
     seconds, scores = time.process_time() - begun, result.metrics
@@ -122,6 +124,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="*", default=())
     parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS)
     parser.add_argument("--harmonics", nargs="*", default=["auto", "0", "2"], choices=["auto", "0", "1", "2", "3"])
+    parser.add_argument("--rate", type=float)
     options = parser.parse_args()
     titles = ("object", "light", "deviation", "harmonics", "Chamfer", "angle", "IoU", "PSNR of the mesh", "CPU s")
     print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}", flush=True)
@@ -133,7 +136,7 @@ def main() -> None:
             scene = replace(relit(views, mesh, kind), normalization=Normalization())
             deviation = f"{make_start(None, scene, config).deviation or 0:.4f}"
             for harmonics in options.harmonics:
-                row = run(mesh, scene, harmonics, options.out / f"{subject.name}_{kind}_{harmonics}")
+                row = run(mesh, scene, harmonics, options.rate, options.out / f"{subject.name}_{kind}_{harmonics}")
                 print(f"| {' | '.join((subject.name, kind, deviation, harmonics, *row))} |", flush=True)
 
 
