@@ -19,13 +19,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import etsplat
 from benchmarks.starts import distance
+from benchmarks.vessels import waves
 from etsplat.core.cameras import camera_centers
 from etsplat.data.dataset import Dataset, Normalization
 from etsplat.data.pictures import StoredPictures
@@ -44,16 +44,6 @@ GLOSS = {"satin": (0.35, 12), "gloss": (0.6, 60)}
 """How bright highlights are, and how narrow."""
 
 KINDS = ("fixed", "flash", "turning", *GLOSS)
-
-
-def painted(vertices: Tensor, seed: int) -> Tensor:
-    """Colours of waves of four lengths that no two sides have alike."""
-    rng, colors = np.random.default_rng(seed), np.full((len(vertices), 3), 0.45)
-    for frequency, amplitude in ((3, 0.06), (7, 0.045), (16, 0.035), (34, 0.03)):
-        for _ in range(6):
-            along = vertices.numpy() @ (frequency * rng.normal(size=3))
-            colors += amplitude * np.sin(along[:, None] + rng.uniform(0, 2 * np.pi, 3)) * rng.normal(size=3)
-    return torch.from_numpy(colors.clip(0.05, 0.8)).float()
 
 
 def lit(kind: str, base: Tensor, vertices: Tensor, normals: Tensor, viewmat: Tensor) -> Tensor:
@@ -75,7 +65,8 @@ def lit(kind: str, base: Tensor, vertices: Tensor, normals: Tensor, viewmat: Ten
 def relit(views: Dataset, mesh: MeshFile, kind: str) -> Dataset:
     """The views of a mesh in another light."""
     vertices, faces = mesh.vertices, mesh.faces
-    normals, base, images = vertex_normals(vertices, faces), painted(vertices, 0), []
+    normals, images = vertex_normals(vertices, faces), []
+    base = torch.from_numpy((0.45 + waves(vertices.numpy(), 0, (0.06, 0.045, 0.035, 0.03))).clip(0.05, 0.8)).float()
     for index in range(len(views.names)):
         colors = lit(kind, base, vertices, normals, views.viewmats[index].float())
         drawn = etsplat.render_opaque(

@@ -163,6 +163,16 @@ VESSELS: dict[str, SignedDistance] = {
 }
 
 
+def waves(vertices: np.ndarray, seed: int, amplitudes: tuple[float, float, float, float]) -> np.ndarray:
+    """(V, 3) colours around 0, of six waves of each of four lengths, that no two sides of a thing have alike."""
+    rng, colors = np.random.default_rng(seed), np.zeros((len(vertices), 3))
+    for frequency, amplitude in zip((3, 7, 16, 34), amplitudes, strict=True):
+        for _ in range(6):
+            along = vertices @ (frequency * rng.normal(size=3))
+            colors += amplitude * np.sin(along[:, None] + rng.uniform(0, 2 * np.pi, 3)) * rng.normal(size=3)
+    return colors
+
+
 def write_vessel(name: str, out: Path, kind: str) -> Path:
     """Its mesh: white, or painted with waves of four lengths that no two of its sides have alike."""
     vertices, faces = dual_contour(VESSELS[name], (-REACH,) * 3, 2 * REACH / CELLS, (CELLS,) * 3)
@@ -170,11 +180,7 @@ def write_vessel(name: str, out: Path, kind: str) -> Path:
         (out / kind).mkdir(exist_ok=True)
         trimesh.Trimesh(vertices, faces, process=False).export(out / kind / f"{name}.ply")
         return out / kind / f"{name}.ply"
-    rng, colors = np.random.default_rng(list(VESSELS).index(name)), np.full((len(vertices), 3), 0.5)
-    for frequency, amplitude in ((3, 0.07), (7, 0.054), (16, 0.043), (34, 0.036)):
-        for _ in range(6):
-            along = vertices @ (frequency * rng.normal(size=3))
-            colors += amplitude * np.sin(along[:, None] + rng.uniform(0, 2 * np.pi, 3)) * rng.normal(size=3)
+    colors = 0.5 + waves(vertices, list(VESSELS).index(name), (0.07, 0.054, 0.043, 0.036))
     mesh = trimesh.Trimesh(
         vertices, faces, process=False, vertex_colors=(255 * colors.clip(0.03, 0.97)).astype(np.uint8)
     )

@@ -84,7 +84,7 @@ class Stepper(Generic[M]):
         _check_names(schedule, model)
         self._device = next(iter(parameters.values())).device
         self.adam = Adam(parameters, dict.fromkeys(parameters, 0.0))
-        self.adam.learning_rates = self._rates(1)
+        self.adam.learning_rates = self._rates(1)  # may ask for its decays
         self._halvings = -1
         self.arrive(0)
         self.queue: StepQueue | None = None
