@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 from mathutils import Matrix, Vector  # pyright: ignore[reportMissingImports]
 
-from benchmarks.unseen_objects.more_shapes import SHAPES
+from benchmarks.unseen_objects.household import SHAPES
 from benchmarks.unseen_objects.surfaces import surface
 
 VIEWS = {"train": (56, -60, 80, 16), "test": (8, -45, 65, 32)}

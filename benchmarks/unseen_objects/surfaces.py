@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from skimage.measure import marching_cubes  # pyright: ignore[reportMissingImports]
 
-from benchmarks.unseen_objects.more_shapes import SHAPES
+from benchmarks.unseen_objects.household import SHAPES
 from benchmarks.unseen_objects.shapes import Grid
 
 GRID = 160
