@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -12,9 +13,8 @@ from benchmarks.unseen_objects.shapes import Field, Grid, union
 def headphones(g: Grid) -> Field:
     """A band over two cups with soft rings: one thin arch, hollows that face each other."""
     band = np.maximum(np.maximum(np.abs(np.hypot(g.x, g.z) - 0.75) - 0.035, np.abs(g.y) - 0.1), -g.z)
-    cups = []
+    cups, around = [], np.hypot(g.y, g.z + 0.1)
     for side in (-1, 1):
-        around = np.hypot(g.y, g.z + 0.1)
         shell = np.maximum(around - 0.35, np.abs(g.x - side * 0.72) - 0.12)
         hollow = np.maximum(around - 0.2, np.abs(g.x - side * 0.55) - 0.2)
         cups.append(np.maximum(shell, -hollow))
@@ -75,11 +75,8 @@ def crown(g: Grid) -> Field:
     top = 0.15 + 0.3 * np.abs(np.cos(3.5 * np.arctan2(g.y, g.x)))
     wall = np.abs(g.around - 0.75 - 0.12 * g.z) - 0.05
     band = np.maximum(np.maximum(wall, g.z - top), -0.4 - g.z) * 0.8
-    balls = []
-    for k in range(7):
-        a = 2 * math.pi * k / 7
-        balls.append(g.ball((0.81 * math.cos(a), 0.81 * math.sin(a), 0.5), 0.085))
-    return union(band, *balls)
+    angles = (math.tau * k / 7 for k in range(7))
+    return union(band, *(g.ball((0.81 * math.cos(a), 0.81 * math.sin(a), 0.5), 0.085) for a in angles))
 
 
 def boat(g: Grid) -> Field:
@@ -120,18 +117,15 @@ def tap(g: Grid) -> Field:
 
 def stairs(g: Grid) -> Field:
     """A spiral: eighteen steps around a pole, with a rail on rods."""
-    parts, last = [g.rod((0, 0, -0.95), (0, 0, 0.95), 0.08)], None
+    parts, tops = [g.rod((0, 0, -0.95), (0, 0, 0.95), 0.08)], []
     for k in range(18):
         a, z = 0.42 * k, -0.85 + 0.1 * k
         c, s = math.cos(a), math.sin(a)
         along, across = c * g.x + s * g.y, -s * g.x + c * g.y
         step = np.maximum(np.maximum(np.abs(along - 0.3) - 0.3, np.abs(across) - 0.13), np.abs(g.z - z) - 0.03)
-        top = (0.57 * c, 0.57 * s, z + 0.2)
-        parts += [step, g.rod((0.57 * c, 0.57 * s, z), top, 0.02)]
-        if last is not None:
-            parts.append(g.rod(last, top, 0.025))
-        last = top
-    return union(*parts)
+        tops.append((0.57 * c, 0.57 * s, z + 0.2))
+        parts += [step, g.rod((0.57 * c, 0.57 * s, z), tops[-1], 0.02)]
+    return union(*parts, *(g.rod(a, b, 0.025) for a, b in pairwise(tops)))
 
 
 SHAPES: dict[str, Callable[[Grid], Field]] = more_shapes.SHAPES | {
